@@ -53,15 +53,22 @@ def _shared_color(images: Sequence[np.ndarray]) -> np.ndarray | None:
 
 
 def _in_mean_light(images: Sequence[np.ndarray]) -> np.ndarray | None:
-    """The colour (3,) of a plain background that photos show in lights of their own; None where too few show one, or
-    they differ by more than exposures do."""
-    found = [color for image in images if (color := _shared_color([image])) is not None]
+    """The colour (3,) of a plain background that photos show in lights of their own; None where too few show one with
+    something before it, or they differ by more than exposures do."""
+    found = []
+    for image in images:
+        color = _shared_color([image])
+        # A wall that fills photos has a colour in each, too.
+        if color is not None and _unlike(np.asarray(image, np.float64), color).mean() >= _LEAST_OBJECT:
+            found.append(np.log(np.maximum(srgb_to_linear(color), 1e-6)))
     if len(found) < _PLAIN_SHARE * len(images):
         return None
-    own = np.array(found, np.float64)
-    middle = linear_to_srgb(np.exp(np.log(np.maximum(srgb_to_linear(own), 1e-6)).mean(axis=0)))
-    alike = sum(_is_exposure(color, middle) for color in own)
-    return middle.astype(np.float32) if alike >= _PLAIN_SHARE * len(images) else None
+    # Not their mean: a single photo with something dark at its border would darken it.
+    middle = linear_to_srgb(np.exp(np.median(found, axis=0)))
+    alike = [light for light in found if _is_exposure(linear_to_srgb(np.exp(light)), middle)]
+    if len(alike) < _PLAIN_SHARE * len(images):
+        return None
+    return np.asarray(linear_to_srgb(np.exp(np.mean(alike, axis=0))), np.float32)
 
 
 def cut_out_background(on_black: Sequence[np.ndarray], on_white: Sequence[np.ndarray]) -> np.ndarray | None:

@@ -117,7 +117,11 @@ def _has_photos(folder: Path) -> bool:
 
 def _is_other(folder: Path) -> bool:
     name = folder.name.lower()
-    return name.startswith((".", "proj")) or name in _OTHER_FOLDERS or (folder / _RUN).is_file()
+    try:
+        return name.startswith((".", "proj")) or name in _OTHER_FOLDERS or (folder / _RUN).is_file()
+    except OSError:
+        # Nobody may look into it: `lost+found` of a disk.
+        return True
 
 
 def _has_xrays(folder: Path) -> bool:

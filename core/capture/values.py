@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
+from ..volume import ARCHIVE_ERRORS
 from .findings import CaptureProblem
 
 
@@ -40,7 +40,7 @@ def read_array(path: Path) -> np.ndarray:
     """The array of an .npy as it is stored. Raises CaptureError when it is damaged, an .npz, or of objects."""
     try:
         array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, TokenError) as error:
+    except ARCHIVE_ERRORS as error:
         raise CaptureProblem(path, "cannot be read as .npy ({error})", "export it again", error=error) from error
     if not isinstance(array, np.ndarray):
         array.close()

@@ -6,7 +6,6 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tokenize import TokenError
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -184,7 +183,7 @@ def _read_npz(path: Path) -> _Grid:
             raise CaptureProblem(path, "is an .npy", "export it as .npz")
         with archive:
             content = {name: archive[name] for name in archive.files}
-    except (*ARCHIVE_ERRORS, TokenError) as error:
+    except ARCHIVE_ERRORS as error:
         raise CaptureProblem(
             path, "is damaged: it cannot be read as .npz ({error})", "save it again", error=error
         ) from error

@@ -36,6 +36,7 @@ from .planned import ALIGNMENT, Plan, ablated, plan_of, with_fewer
 from .plot import draw_plot
 from .score import row_figures, truth_figures
 from .sections import SectionJudge
+from .sharing import without_none
 from .starts import errors_of, random_starts
 from .study import FIGURES, Made, Study, kept_figures, machine_of, mark, refuse_foreign, study_folder
 from .tables import markdown
@@ -188,17 +189,9 @@ def row_settings(settings: Settings) -> dict[str, str]:
             unused = {*method.leave_out, *(("align", "internal", "fuse") if method.modality == "photos" else ())}
             of = plain({stage: one for stage, one in chosen.stages.items() if stage not in unused})
             of["surface"].pop({"photos": "xray", "xray": "rgb"}.get(method.modality), None)
-        content = json.dumps(_without_none(of), sort_keys=True)
+        content = json.dumps(without_none(of), sort_keys=True)
         digests[method.name] = hashlib.sha256(content.encode()).hexdigest()[:12]
     return digests
-
-
-def _without_none(plain_settings: Any) -> Any:
-    if isinstance(plain_settings, dict):
-        return {name: _without_none(value) for name, value in plain_settings.items() if value is not None}
-    if isinstance(plain_settings, list):
-        return [_without_none(value) for value in plain_settings]
-    return plain_settings
 
 
 def _same(settings: Settings, count: int) -> Settings:

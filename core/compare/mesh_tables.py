@@ -81,7 +81,10 @@ def _lines(name: str, one: Figures) -> list[str]:
     if not measured or not _meshes_of(one):
         return []
     if truth["inner_left_out"] == 1.0:
-        return [f"- {name}: there are no inner figures, since at all of its inner surfaces two materials meet."]
+        return [
+            f"- {name}: there are no inner figures, since at all of its inner surfaces two materials meet, or the air "
+            "is too thin for the truth's voxels."
+        ]
     return [
         f"- {name}: inner figures are of {measured} of the area of the true inner surfaces; at the rest two materials "
         "meet, or the air is too thin for the truth's voxels. A room that is open to the outside counts as outer."

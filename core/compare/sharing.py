@@ -121,10 +121,19 @@ def _same(other: RunFolder, settings: Settings, stage: str, part: str | None = N
         return False
     if part is not None and "seconds" not in (report.get(part) or {}):
         return False
-    made, asked = report.get("settings"), plain(settings.stages[stage])
+    made, asked = without_none(report.get("settings")), without_none(plain(settings.stages[stage]))
     if part is not None and made is not None and part in asked:
         return made[part] == asked[part]
     return made is None or made == asked
+
+
+def without_none(plain_settings: Any) -> Any:
+    """Settings without those that are None, off: these count as if there were no such setting, as before there was."""
+    if isinstance(plain_settings, dict):
+        return {name: without_none(value) for name, value in plain_settings.items() if value is not None}
+    if isinstance(plain_settings, list):
+        return [without_none(value) for value in plain_settings]
+    return plain_settings
 
 
 def _copy_stage(source: Path, target: Path) -> None:

@@ -17,12 +17,13 @@ from torch import Tensor
 from ..errors import SettingError
 from ..gaussians import GaussianSet
 from ..render.splat import SplatImage
+from ..srgb import srgb_to_linear
 from ..told import Told
 from ..train.schedule import Decay
 from ..views import Camera
 from .finding import EffectFinding
 from .imaging import Draw, Effect
-from .look.colors import Colors, View, of_borders, of_objects, of_points
+from .look.colors import BRIGHTEST, DARKEST, Colors, View, of_borders, of_objects, of_points
 from .look.gains import photo_levels
 from .numbers import PhotoNumbers
 from .photos import PhotoEvidence
@@ -151,14 +152,15 @@ class Exposure:
     """Colours times exp(a / 2.2), a photographed background's, too, with three numbers a for each photo: log gains of
     light.
 
-    Their mean over the photos stays 0, for no photo tells how bright the object is; before a plain background its
-    colour does. What is brighter than white is white in the photo as well.
+    Their mean over the photos stays 0, for no photo tells how bright the object is; before a plain background, neither
+    black nor white, its colour does. What is brighter than white is white in the photo as well.
 
     Attributes:
         rate: Adam's, of a.
         behind: a colour in 0..1 that was put behind objects which were cut out: no camera exposed it. None where what
             is behind them was photographed.
-        plain: what was photographed behind them is one colour, which the model is drawn before.
+        plain: what was photographed behind them is one colour, neither black nor white, which the model is drawn
+            before.
     """
 
     rate: Decay = Decay(0.02, 0.002)
@@ -209,7 +211,7 @@ class ExposureImaging:
         self._numbers.forget_gradients()
 
     def starts(self, draw: Draw, gaussians: GaussianSet, camera: Camera) -> list[Tensor]:
-        """The mean of all photos."""
+        """The plain background's, or the mean of all photos."""
         return [torch.zeros(3)]
 
     def alone(self, camera: Camera, numbers: Tensor) -> ExposureImaging:
@@ -217,7 +219,8 @@ class ExposureImaging:
         return ExposureImaging(self._settings, PhotoNumbers(numbers[None]))
 
     def report(self) -> dict[str, Any]:
-        """Gains of red, green and blue light of each photo; but before a plain background their product is 1."""
+        """Gains of red, green and blue light of each photo, over the background's where that is plain; elsewhere their
+        product is 1."""
         return {"gain": self._numbers.values.exp().tolist()}
 
     def state(self) -> dict[str, Any]:
@@ -237,5 +240,8 @@ def before(effects: Sequence[Effect], background: np.ndarray | None, is_put: boo
     if background is None:
         return tuple(effects)
     red, green, blue = (float(value) for value in background)
-    known: dict[str, Any] = {"behind": (red, green, blue)} if is_put else {"plain": True}
+    light = srgb_to_linear(np.asarray(background))
+    # Black is as black in any exposure, and what is cut off at white as white.
+    told = bool((light >= DARKEST).all() and (light <= BRIGHTEST).all())
+    known: dict[str, Any] = {"behind": (red, green, blue)} if is_put else {"plain": told}
     return tuple(replace(one, **known) if isinstance(one, Exposure) else one for one in effects)

@@ -204,21 +204,23 @@ def _changes(values: np.ndarray, air: np.ndarray) -> np.ndarray:
 def _local(light: np.ndarray, explained: np.ndarray) -> bool:
     """Whether much of what changes in air (M, height, width) is not what scattered light explains of it, but local."""
     side = max(2, max(light.shape[1:]) // _CELLS)
-    left, own = _in_cells(light - explained, side), _in_cells(explained, side)
+    # Of a low, wide detector cells are lower, so that there are some one above the other.
+    down, across = (min(side, max(count // (_APART + 1), 1)) for count in light.shape[1:])
+    left, own = _in_cells(light - explained, down, across), _in_cells(explained, down, across)
     total, variance, allowed = 0.0, 0.0, 0.0
     for axis in (1, 2):
         alike = _with_next(left, axis)
         total += float(alike.sum())
         variance += float((alike**2).sum())
         allowed += _MOST_LEFT * float(_with_next(own, axis).sum())
-    return total - _SURELY_LEFT * np.sqrt(variance) > allowed
+    return bool(total - _SURELY_LEFT * np.sqrt(variance) > allowed)
 
 
-def _in_cells(values: np.ndarray, side: int) -> np.ndarray:
-    """(M, rows, columns) means of square cells of so many pixels a side; the rest at the border is left out."""
-    rows, columns = (count // side for count in values.shape[1:])
-    whole = values[:, : rows * side, : columns * side]
-    return np.asarray(whole.reshape(len(values), rows, side, columns, side).mean(axis=(2, 4)))
+def _in_cells(values: np.ndarray, down: int, across: int) -> np.ndarray:
+    """(M, rows, columns) means of cells of so many pixels a side; the rest at the border is left out."""
+    rows, columns = values.shape[1] // down, values.shape[2] // across
+    whole = values[:, : rows * down, : columns * across]
+    return np.asarray(whole.reshape(len(values), rows, down, columns, across).mean(axis=(2, 4)))
 
 
 def _with_next(cells: np.ndarray, axis: int) -> np.ndarray:

@@ -122,7 +122,8 @@ def _row(study: Study, position: Position, judge: SectionJudge | None) -> dict[s
         seen = position.thin(seen)
     folder = study.folder / method.name
     try:
-        made = Made(method, folder, study.run(folder, seen, position.change(study.settings), title=method.label))
+        changed = position.change(study.settings)
+        made = Made(method, folder, study.run(folder, seen, changed, title=method.label, code=method.code))
     except CaptureError as error:
         hint = f" (--knobs without {position.knob} goes on.)" if position.knob in KNOBS else ""
         raise CaptureError(f"row '{method.label}': {error}{hint}") from error

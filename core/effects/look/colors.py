@@ -19,7 +19,7 @@ View = tuple[np.ndarray, Camera]
 # Of the sparse points that a photo sees, those that most others see, too: of them all whole sides could be missing.
 _POINTS_A_PHOTO = 200
 # Light below is noise, and sRGB no power of it; light above is cut off.
-_DARKEST, _BRIGHTEST = 0.05, 0.9
+DARKEST, BRIGHTEST = 0.05, 0.9
 # Of sRGB; parts of a border that are farther from the rest show something else.
 _ALIKE = 0.06
 _FEWEST_PIXELS = 50
@@ -82,5 +82,5 @@ def of_objects(views: Sequence[View]) -> np.ndarray:
 
 
 def _comparable(light: np.ndarray) -> np.ndarray:
-    known = (light >= _DARKEST) & (light <= _BRIGHTEST)
+    known = (light >= DARKEST) & (light <= BRIGHTEST)
     return np.where(known, np.log(np.where(known, light, 1.0)), np.nan)

@@ -110,10 +110,6 @@ def refine_jointly(
     before = _figures(context, photos, projections, trainer)
     history = optimise(trainer, task, context.reporter)
     result = trainer.parameters.to_set()
-    if not settings.photos_attenuate:
-        # What stands for 0 in a softplus is not quite 0.
-        none = np.zeros(1, np.float32)
-        result = replace(result, density=np.where(result.modality == Modality.RGB, none, result.density))
     report = {**history, "before": before, "after": _figures(context, photos, projections, trainer)}
     report["trained_with"] = plain(settings)
     attenuates = result.density >= _LEAST_DENSITY * unit

@@ -47,6 +47,20 @@ def test_one_that_photos_show_in_lights_of_their_own_is_plain_too(stops):
         assert (mask & disc).sum() / (mask | disc).sum() > 0.95
 
 
+def test_one_photo_with_something_dark_at_its_border_darkens_no_background():
+    gains = 2 ** (0.4 * np.array([-1.2, 0.4, 1.1, -0.3, 0.9, -0.9, 0.2, -0.6, 0.4]))
+    lights = [np.clip(gain * srgb_to_linear(_photo(seed)[0]), 0, 1) for seed, gain in enumerate(gains)]
+    near = np.where(_photo(9)[1][..., None], 0.4, 0.0008) * np.ones(3)
+    found = plain_background([linear_to_srgb(light) for light in [*lights, near]])
+    assert found == pytest.approx(GREY, abs=0.02)
+
+
+def test_a_wall_that_fills_photos_in_several_exposures_is_no_background():
+    rng = np.random.default_rng(0)
+    walls = [linear_to_srgb(gain * 0.3) + rng.normal(0, 0.005, (80, 100, 3)) for gain in (0.6, 1.0, 1.8)]
+    assert plain_background(walls) is None
+
+
 def test_backgrounds_of_several_colours_are_none():
     grey, blue = _photo(0)[0], np.where(_photo(1)[1][..., None], 0.2, [0.2, 0.3, 0.7])
     assert plain_background([grey, blue, grey, blue]) is None

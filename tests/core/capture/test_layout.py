@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -79,3 +81,19 @@ def test_what_is_no_half_of_a_capture_is_not(tmp_path, values):
     volume(both / "CT", values)
     for folder in (only_xrays, only_photos, both):
         assert not warned(folder, "not read")
+
+
+def test_a_folder_that_nobody_may_look_into_is_passed_over(tmp_path, values, monkeypatch):
+    """As `lost+found` of a disk, to whose first folder a scan was written."""
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / "scan.nii.gz"))
+    (tmp_path / "lost+found").mkdir()
+    usual = Path.is_file
+
+    def is_file(path):
+        if path.parent.name == "lost+found":
+            raise PermissionError(13, "Permission denied", str(path))
+        return usual(path)
+
+    monkeypatch.setattr(Path, "is_file", is_file)
+    assert read_capture(tmp_path).volume is not None
+    assert not [one for one in check_capture(tmp_path) if "lost+found" in str(one.subject)]

@@ -114,6 +114,12 @@ def test_before_a_plain_background_its_colour_tells_how_bright_photos_are(walls)
     assert (gains[0] < np.exp(0.5)).all()
 
 
+@pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (0.05, 0.9, 0.2), (1.0, 1.0, 1.0)])
+def test_a_background_that_shows_no_exposure_tells_none(color):
+    """Black cloth is as black in any, a green screen as free of red, and what is cut off at white as white."""
+    assert before([Exposure()], np.float32(color), False) == (Exposure(),)
+
+
 def test_it_comes_after_lens_and_shutter():
     """Light is weighed when it has arrived."""
     from insideout.core.effects import EFFECTS

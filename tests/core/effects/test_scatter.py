@@ -174,6 +174,18 @@ def test_posts_and_foam_that_count_as_air_are_no_scatter(things, views, beside, 
     assert "not as smooth" in finding.reason
 
 
+@pytest.mark.parametrize(("local", "rows"), [(True, 20), (True, 200), (False, 20), (False, 200)])
+def test_what_is_local_shows_on_low_and_wide_detectors_too(local, rows):
+    """Of fewer rows than a cell is wide: cells are as low as it takes for some to lie one above the other."""
+    rng = np.random.default_rng(0)
+    changes = rng.normal(0, 0.01, (24, rows, 1000))
+    explained = 0.002 * rng.standard_normal((24, 1, 1)) * np.ones_like(changes)
+    changes += explained
+    if local:
+        changes[:, :, 300:420] += 0.01 * rng.standard_normal((24, 1, 1))
+    assert bool(scatter._local(changes, explained)) is local
+
+
 @pytest.mark.parametrize("share", [0.05, 0.1, 0.3])
 def test_beside_nothing_the_same_body_scatters(share, beside, seen):
     finding = seen(scattered(beside([]), share))

@@ -1,5 +1,6 @@
 """How long a step takes here: measured with splats that lie as a model's would, on the capture's own images."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,10 +11,10 @@ from PIL import Image
 
 from insideout.core.capture.model import Photo, Photos
 from insideout.core.capture.read import read_capture
-from insideout.core.effects import RollingShutter
+from insideout.core.effects import Exposure, MotionBlur, RollingShutter
 from insideout.core.forecast.crowd import object_cells
 from insideout.core.forecast.detail import look_at_photos
-from insideout.core.forecast.speed import before_the_object, measure_speed, photo_size
+from insideout.core.forecast.speed import StepTime, before_the_object, measure_speed, photo_size
 from insideout.core.render import radiograph, section
 from insideout.core.sections import choose_planes
 from insideout.core.stages.surface.rgb import RgbSettings, RgbTrainer
@@ -192,3 +193,37 @@ def test_colours_are_timed_as_they_are_trained(capture, monkeypatch):
     )
     assert sixteen == pytest.approx(4 * four, rel=0.01)
     assert sorted(set(drawn)) == [1, 3]
+
+
+def test_steps_of_a_training_gain_less_by_threads_than_those_that_are_timed(capture, monkeypatch):
+    """With a gain of three they take 1.56 times as long over these; with none, as long."""
+
+    def steps(alone):
+        monkeypatch.setattr("insideout.core.forecast.speed.Alone", lambda wanted: nullcontext())
+        times = iter([0.01, alone])
+        monkeypatch.setattr("insideout.core.forecast.speed._cube_time", lambda tick: next(times))
+        monkeypatch.setattr("numba.get_num_threads", lambda: 2)
+        for kind in ("photo", "projection", "section"):
+            monkeypatch.setattr(f"insideout.core.forecast.speed._{kind}_time", lambda *_: StepTime(1.0, 0.1, 0.01))
+        speed = measure_speed(capture, 64)
+        return speed.photo, speed.projection, speed.section
+
+    assert steps(0.01) == (StepTime(1.0, 0.1, 0.01),) * 3
+    for step in steps(0.03):
+        assert (step.fixed, step.by_splat, step.by_pixel) == pytest.approx((1.56, 0.156, 0.0156))
+
+
+def test_a_camera_that_moves_is_timed_as_far_on_its_way_as_photos_show_it(capture, monkeypatch):
+    """A training begins with a pixel of motion, which is drawn as five views; what is found has moved by more."""
+    views = []
+
+    class Watched(RgbTrainer):
+        def __init__(self, start, photos, heldout, background, settings, *rest):
+            views.append(settings.effects)
+            super().__init__(start, photos, heldout, background, settings, *rest)
+
+    monkeypatch.setattr("insideout.core.stages.surface.rgb.RgbTrainer", Watched)
+    measure_speed(capture.photos_only(), 64, rgb=RgbSettings(effects=(MotionBlur(), Exposure())))
+    (timed,) = set(views)
+    assert timed[0].start_px > 2 * MotionBlur().start_px
+    assert timed[1] == Exposure()
