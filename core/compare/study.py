@@ -197,12 +197,15 @@ class Study:
         return {"stages": {stage: run.report(stage) for stage in stages}}
 
     def seen_by(self, method: Method) -> Capture:
-        """The part of the capture that a method sees; beside a truth, photos with the cameras that the InsideOut row
-        found, so that all rows share a photo frame."""
+        """The part of the capture that a method sees; photos with the cameras that the InsideOut row found, so that
+        all rows share a photo frame."""
         capture, kept = self.capture, self.folder / _REFERENCE / "initialize" / "photos.json"
-        # Without a truth there is no frame to share: a row keeps the cameras that it found before the InsideOut row.
-        others = method.name != _REFERENCE and method.modality != "xray" and self.truth is not None
-        if capture.photos is not None and not capture.photos.posed and others:
+        others = method.name != _REFERENCE and method.modality != "xray"
+        if self.truth is None:
+            # There is no frame to share: a row keeps the cameras that it found before the InsideOut row did.
+            begun = read_dict(self.folder / method.name / "capture.json") or {}
+            others = others and begun.get("digest") not in (capture.digest, capture.photos_only().digest)
+        elif capture.photos is not None and not capture.photos.posed and others:
             # Which measures them in its frame in any case.
             self.reference()
         if capture.photos is not None and not capture.photos.posed and others and kept.exists():

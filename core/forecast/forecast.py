@@ -16,7 +16,7 @@ from ..evaluate.report import PHOTO_SIZE
 from ..evaluate.residual import MOST_VIEWS
 from ..settings import Settings
 from ..stages.internal.joint_settings import joint_of, without_photos
-from ..stages.measures import measured_with_effects
+from ..stages.measures import UNTIL, measured_with_effects
 from .fitting import FORWARD, learnt_effects, steps_to_measure
 from .growth import grown, mean_step, splats_then
 from .pace import measuring_of
@@ -409,9 +409,10 @@ class _Plan:
             found |= self._on_the_way("internal joint", lambda _: both, joint.photo_size)
             return found | self._beside("fuse measuring", [both], self._stages["fuse"].photo_size)
         follows = settings.xray_iterations if self._capture.can_follow_volume else 0
-        # What densities follow is also what they are measured by: before, twice on the way, and after.
+        # What densities follow is also what they are measured by: before, on the way, and after.
         whole = self._averaging() if self._capture.can_follow_volume else 0.0
-        measured = {measuring_of("internal xray"): 2 * whole, "internal voxels after": whole}
+        times = 2 if self._settings.until_db is None else UNTIL
+        measured = {measuring_of("internal xray"): times * whole, "internal voxels after": whole}
         found = {"internal voxels": whole, "internal xray": follows * (cut + ray), **measured, **display}
         if photo is not None:
             fuse = self._stages["fuse"]
