@@ -97,7 +97,8 @@ def _before_save(*_: Any) -> None:
     """Leaves models out of the file that are deleted, but not out of memory, where an undo finds them."""
     for scene in bpy.data.scenes:
         model = scene.insideout.model
-        if model is None or model.users_collection or not scene.is_editable:
+        # Without their parent those that hang on it would come back elsewhere.
+        if model is None or model.users_collection or model.children or not scene.is_editable:
             continue
         # As no model: no picture need be drawn.
         scene.insideout.property_unset("model")

@@ -244,7 +244,7 @@ class InsideOutSettings(bpy.types.PropertyGroup):
         "panels",
         **_FOLDER,
     )
-    filled_run: StringProperty(description="The run folder that was filled in for a capture, where nobody chose one")
+    filled_run: StringProperty(description="Run folder that was filled in, where nobody chose one", **_FOLDER)
     preset: EnumProperty(
         name="Preset",
         description="How much time a reconstruction takes, and how accurate the model gets",

@@ -180,7 +180,7 @@ def start_run(operator: bpy.types.Operator, scene: bpy.types.Scene) -> set[str]:
 
     def on_start() -> None:
         if not settings.run or absolute(settings.run) != run:
-            settings.run, settings.filled_run = str(run), displayable(run)
+            settings.run = settings.filled_run = str(run)
         # Pressed again, the button goes on with this run.
         state.start_over = False
 
@@ -218,8 +218,9 @@ def absolute(path: str) -> Path:
 
 def _run_of(settings: bpy.types.PropertyGroup, capture: Path) -> Path:
     """Where the next run goes, and the last one may lie: what was filled in for one capture is not another's."""
-    chosen = settings.run and displayable(absolute(settings.run)) != settings.filled_run
-    return absolute(settings.run) if chosen else default_run(capture)
+    # Both as Blender writes paths: with the file they go elsewhere.
+    filled = settings.filled_run and absolute(settings.run) == absolute(settings.filled_run)
+    return absolute(settings.run) if settings.run and not filled else default_run(capture)
 
 
 def run_elsewhere(settings: bpy.types.PropertyGroup) -> Path | None:

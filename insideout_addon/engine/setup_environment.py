@@ -66,9 +66,6 @@ class Told(dict[str, object]):
         template, values = str(self["template"]), self["values"]
         return template.format(**values) if values else template
 
-    def __format__(self, _: str) -> str:
-        return str(self)
-
 
 class _MakingError(Exception):
     """Why it could not be made, in words of our own."""

@@ -129,13 +129,13 @@ def release_soft(model: bpy.types.Object) -> None:
 
 
 def deleted_colliders() -> list[tuple[bpy.types.Collection, bpy.types.Object]]:
-    """(collection of a soft body's, what is in it) where the latter is in no scene any more, and fallen onto there."""
+    """(collection of a soft body's, what is in it) where the latter is in no other any more, and fallen onto there."""
     return [
         (collection, thing)
         for collection in bpy.data.collections
         if _COLLIDERS_KEY in collection and collection.is_editable
         for thing in collection.objects
-        if not thing.users_scene
+        if thing.library is None and all(_COLLIDERS_KEY in one for one in thing.users_collection)
     ]
 
 

@@ -18,12 +18,14 @@ from ...core.densities import Densities
 from ...core.gaussians import GaussianSet
 from ...core.ply import write_in_steps
 from ...core.steps import part_of_work, run_through
-from .following import Bending, bending_of
+from .display import display_modifier
+from .following import Bending, bending_of, following_modifier
 from .importing import TOLD_KEY, WARNINGS_KEY, densities_are_relative
-from .node_tree import STAMP_KEY, modifier_input, set_modifier_input
+from .node_tree import modifier_input, set_modifier_input
 from .placement import LEFT_BEHIND, denser_by, moved_since_import, splats_are_left_behind
 from .provenance import comment_lines, provenance_of, stamp
 from .run_facts import facts_to_export
+from .section_cut import cut_modifiers
 from .splats import WATER_KEY, WHOLE_SCALE, DamagedSplatsError, in_scene, read_in_steps, read_splats, read_values
 
 # Node groups of this add-on: they show a model and are no edit of it.
@@ -72,7 +74,8 @@ def model_to_export(context: bpy.types.Context) -> bpy.types.Object | None:
 
 def is_edited_by_modifiers(model: bpy.types.Object) -> bool:
     """Whether the user's modifiers change the splats: the view and an export have that, sections and weights do not."""
-    return any(modifier.show_viewport and not _is_ours(modifier) for modifier in model.modifiers)
+    ours = _ours(model)
+    return any(modifier.show_viewport and modifier not in ours for modifier in model.modifiers)
 
 
 def edited_splats(
@@ -177,7 +180,7 @@ def _evaluated(model: bpy.types.Object, context: bpy.types.Context, visible_only
     context.scene.collection.objects.link(copy)
     try:
         copy.hide_viewport = False
-        for modifier in [m for m in copy.modifiers if _is_ours(m)]:
+        for modifier in _ours(copy):
             if visible_only:
                 _show_what_is_not_cut(modifier)
             else:
@@ -220,9 +223,11 @@ def _warnings(gaussians: GaussianSet, imported: dict[str, Any]) -> Iterator[str]
         yield told.format(count=len(gaussians) - count)
 
 
-def _is_ours(modifier: bpy.types.Modifier) -> bool:
-    group = modifier.node_group if modifier.type == "NODES" else None
-    return group is not None and (STAMP_KEY in group or group.name.startswith(_OURS))
+def _ours(model: bpy.types.Object) -> list[bpy.types.Modifier]:
+    """What shows, cuts and bends the splats, whatever it was renamed to; not the user's own copies of that."""
+    known = [display_modifier(model), following_modifier(model), *cut_modifiers(model)]
+    named = [m for m in model.modifiers if m.type == "NODES" and m.node_group and m.node_group.name.startswith(_OURS)]
+    return [modifier for modifier in model.modifiers if modifier in known or modifier in named]
 
 
 def _show_what_is_not_cut(modifier: bpy.types.NodesModifier) -> None:

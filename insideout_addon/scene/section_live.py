@@ -21,7 +21,6 @@ from .look import apply_look
 from .node_tree import modifier_input
 from .older_files import take_over
 from .section import shown_sections
-from .section_applied import take_back_apply
 from .section_box import shape_box
 from .section_clip import other_cuts, place_in_model
 from .section_cut import apply_cuts
@@ -322,8 +321,6 @@ def on_evaluation(scene: bpy.types.Scene, _: object = None) -> None:
 @persistent
 def on_depsgraph_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Handler: a plane, a box, the model or the cage that it follows was moved, deleted or edited."""
-    if depsgraph.mode == "VIEWPORT":
-        _take_back_applied(scene)
     settings, model = scene.insideout, shown_model(scene)
     cage = None if model is None else cage_of(model)
     lost = bool(lost_sections(scene))
@@ -376,7 +373,6 @@ def on_undone(scene: bpy.types.Scene, _: object = None) -> None:
     So are cuts taken away whose plane was deleted by hand: where that plane is back, Blender leaves the model uncut.
     """
     for other in bpy.data.scenes:
-        _take_back_applied(other)
         if shown_sections(other):
             apply_cuts(other)
         if other == scene or shown_sections(other):
@@ -388,13 +384,6 @@ def on_file_loaded(_: object) -> None:
     """Handler: another file; the splats kept for sections are of the one before."""
     _forget()
     take_over()
-    for scene in bpy.data.scenes:
-        _take_back_applied(scene)
-
-
-def _take_back_applied(scene: bpy.types.Scene) -> None:
-    for section in shown_sections(scene):
-        take_back_apply(section)
 
 
 def _forget_bent(scene: bpy.types.Scene) -> None:

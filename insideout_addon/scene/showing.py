@@ -132,12 +132,11 @@ def add_box(splats: bpy.types.Object, context: bpy.types.Context) -> bpy.types.O
 
 
 def deleted_boxes() -> list[tuple[bpy.types.Object, bpy.types.Object]]:
-    """(model, its box) where the box is in no scene any more, and chooses splats there still."""
-    return [
-        (model, box)
-        for model in bpy.data.objects
-        if model.type == "POINTCLOUD" and model.is_editable and (box := _box(model)) is not None and not box.users_scene
-    ]
+    """(model, its box) where the box is in no collection any more, and chooses splats there still; one of another file
+    may never have been in any here."""
+    models = [thing for thing in bpy.data.objects if thing.type == "POINTCLOUD" and thing.is_editable]
+    pairs = [(model, box) for model in models if (box := _box(model)) is not None]
+    return [(model, box) for model, box in pairs if box.library is None and not box.users_collection]
 
 
 def use_box(splats: bpy.types.Object, box: bpy.types.Object | None) -> None:

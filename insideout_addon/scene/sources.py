@@ -26,7 +26,7 @@ from .provenance import provenance_of
 
 SOURCE_KEY = "insideout_source"
 # Of a scene's settings; what the user chose stays relative where it was.
-_SETTINGS = ("capture", "run")
+_SETTINGS = ("capture", "run", "filled_run")
 # On a scene of an open file: the folder of the .blend that these are seen from. An undo brings both back.
 _SEEN_FROM = "insideout_seen_from"
 _RELATIVE = "//"

@@ -195,6 +195,8 @@ class TestModel:
         save(tmp_path / "a.blend")
         bpy.context.view_layer.update()
         assert ruler.matrix_world == before
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+        np.testing.assert_allclose(bpy.data.objects["ruler"].matrix_world.translation, (50, 0, 0), atol=1e-4)
 
     def test_one_that_is_in_another_scene_or_has_a_fake_user_is_saved(self, model, tmp_path):
         model.use_fake_user = True

@@ -340,6 +340,19 @@ class TestTheRunFolderThatWasFilledIn:
         assert runs("a") == tmp_path / "a run"
         assert runs("b") == tmp_path / "b run"
 
+    def test_follows_it_after_the_project_was_moved(self, runs, tmp_path):
+        project, moved = tmp_path / "project", tmp_path / "moved"
+        project.mkdir()
+        runs("project/a")
+        bpy.ops.wm.save_as_mainfile(filepath=str(project / "a.blend"), relative_remap=True)
+        project.rename(moved)
+        bpy.ops.wm.open_mainfile(filepath=str(moved / "a.blend"))
+        bpy.context.scene.insideout.import_when_done = False
+        assert Path(bpy.path.abspath(bpy.context.scene.insideout.run)) == moved / "a run"
+        bpy.context.scene.insideout.capture = str(moved / "b")
+        assert bpy.ops.insideout.reconstruct() == {"FINISHED"}
+        assert Path(bpy.path.abspath(bpy.context.scene.insideout.run)) == moved / "b run"
+
     def test_stays_where_it_was_chosen(self, runs, tmp_path):
         runs("a")
         bpy.context.scene.insideout.run = str(tmp_path / "mine")

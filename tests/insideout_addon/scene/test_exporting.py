@@ -428,3 +428,11 @@ def test_the_file_says_where_the_model_is_from(load, tmp_path):
     assert 'insideout file.name = "fused.ply"' in comments
     assert 'insideout unit = "mm"' in comments
     assert any(comment.startswith("insideout exported.date = ") for comment in comments)
+
+
+def test_a_copy_of_our_nodes_that_the_user_has_made_his_own_is_an_edit(load):
+    model, _ = load()
+    own = display_modifier(model).node_group.copy()
+    own.name = "My crop"
+    model.modifiers.new("mine", "NODES").node_group = own
+    assert is_edited_by_modifiers(model)
