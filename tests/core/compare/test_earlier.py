@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from insideout import __version__
-from insideout.core.compare.compare import _Tables, _without_none, row_settings
+from insideout.core.compare.compare import _Tables, row_settings
 from insideout.core.compare.earlier import _is_by_other_code
 from insideout.core.compare.methods import with_xray
 from insideout.core.compare.options import CompareSettings
+from insideout.core.compare.sharing import without_none
 from insideout.core.compare.study import FIGURES
 from insideout.core.errors import RunFolderError, SettingError
 from insideout.core.files import write_json
@@ -183,7 +184,7 @@ def test_what_is_off_and_the_half_that_a_row_does_not_see_change_no_row_s_settin
     assert {"insideout", "additive", "ablation/xray_half"} <= changed
     assert not changed & {"3dgs", "mcmc", "gs2mesh", "r2_gaussian", "naf", "fdk"}
     assert xray.smooth_trial is None
-    assert _without_none({"a": {"b": None, "c": [1, {"d": None}]}}) == {"a": {"c": [1, {}]}}
+    assert without_none({"a": {"b": None, "c": [1, {"d": None}]}}) == {"a": {"c": [1, {}]}}
 
 
 def test_a_file_of_something_else_is_refused(earlier):
